@@ -175,6 +175,7 @@ _DROPPED: dict[type, set[str]] = {
     Rewards: {"clock", "flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
+_OLD_TROT = {"back_gain": 1.0, "side_gain": 1.0}  # before these were settings
 _OLD_RAMP = {"first": 1.0, "last": 1.0, "begin": 0.0, "end": 0.0}  # four settings before version 3
 
 
@@ -258,11 +259,12 @@ def _first_gait_imitated(kind: Kind) -> Run:
             steps_per_environment=steps, epochs=3, critic_warmup=40, freeze_normaliser=True,
             desired_kl=0.02 if without_memory else 0.01, learning_rate=1e-5, discount=0.97,
             gae_lambda=0.9,
-            exploration=Exploration((0.02, 0.01), (0.0, 2.5)),
+            exploration=Exploration((0.025, 0.008), (0.0, 4.0)),
             mirror=without_memory, averaging=50,
         ),
-        imitation=Imitation(rollouts=240 // steps, minibatches=4 if without_memory else 16),
-        environments=512, iterations=8000 // steps,
+        # after 8 rounds a policy walks as well as after 12
+        imitation=Imitation(8, rollouts=240 // steps, minibatches=4 if without_memory else 16),
+        environments=512, iterations=16_000 // steps,
     )  # fmt: skip
 
 
@@ -385,6 +387,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[Place, int]]:
     if not isinstance(content, dict) or content.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
     refuse_other_version(path, content.get("schema_version"), RUN_VERSION)
+    with suppress(KeyError, TypeError):  # refused later
+        task = content["settings"]["task"]
+        task["trot"] = {**_OLD_TROT, **task["trot"]}
     if content["schema_version"] < 3:
         with suppress(KeyError, TypeError, AttributeError):  # refused later
             ramps = content["settings"]["task"]["curriculum"]

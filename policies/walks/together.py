@@ -33,8 +33,7 @@ from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import TRUNK_BOX_AT_M, TRUNK_BOX_M
 from pupper_sysid.sim.robot.robot_batch import RobotBatch, trunk_velocity
 from pupper_sysid.sim.robot.terrain import STAIRS_M
-from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Commands, Curriculum, Walking
+from pupper_sysid.sim.walking.config import Commands, Curriculum, Walking
 from pupper_sysid.sim.walking.draws import OF_MOTOR, Twins, at_rest, command_ends
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
@@ -181,7 +180,7 @@ RANDOM = Commands((-0.2, 0.2), (-0.1, 0.1), (-0.5, 0.5), standing=0.0, single=0.
 
 Walker = Literal["policy", "trot", "standing"]
 """By what a robot walks: the policy; an open-loop trot with a clock, which sees nothing but its
-command (`Trot()`, or the one that the training fitted to its servos); or set-points that stay."""
+command (that of the task, with which a training began); or set-points that stay."""
 
 Change = Callable[[int, NDArray[np.float32]], NDArray[np.floating]]
 """`change(step, observation)` returns the observation, shape (n, 60), for the policy; it may alter
@@ -477,9 +476,7 @@ class _Group:
             np.flatnonzero(np.repeat([c.walker == w for c in conditions], np.diff(ends)))
             for w in ("policy", "trot")
         )
-        # beside a policy: the usual trot, or that which was fitted to its servos
-        usual = task.body.is_mini_pupper and task.trot in [p.trot for p in PRESETS.values()]
-        self.trot = Trot() if usual else task.trot
+        self.trot = task.trot
         self.last = np.zeros(len(conditions), int)  # steps until none of a condition was up
 
     def walk(self, advance: Callable[[float], bool]) -> bool:

@@ -25,11 +25,11 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.tiny_training import CALIBRATION, tiny_run
 
 GOOD = GaitScore(
-    score=0.8, falls=0.0, forward_share=1.0, turn_share=1.0, speed_error_m_s=0.017,
-    mean_speed_error_m_s=0.005, turn_error_rad_s=0.072, mean_turn_error_rad_s=0.027,
-    clearance_p10_m=0.006, low_swing_share=0.02, saturated_share=0.3,
+    score=0.8, falls=0.0, forward_share=1.0, turn_share=1.0, speed_error_m_s=0.0155,
+    mean_speed_error_m_s=0.0032, turn_error_rad_s=0.056, mean_turn_error_rad_s=0.021,
+    clearance_p10_m=0.009, low_swing_share=0.02, saturated_share=0.3,
 )  # fmt: skip
-BAD = replace(GOOD, score=0.3, forward_share=0.4, speed_error_m_s=0.034, turn_error_rad_s=1.0)
+BAD = replace(GOOD, score=0.3, forward_share=0.4, speed_error_m_s=0.031, turn_error_rad_s=1.0)
 FITTED = Trot(frequency_hz=2.5, duty=0.7, lift_m=0.02, crouch_m=0.01, spread_m=0.002)
 
 
@@ -38,7 +38,7 @@ def walked(command, shares) -> first_gait._Walked:
     velocity = np.tile(command * shares, (5, 1, 1))
     up = np.ones(velocity.shape[:2], bool)
     return first_gait._Walked(
-        np.ones(3), 1.0, command, velocity, velocity, up, np.array([0.006]), 0.2, 0.3, 0.1
+        np.ones(3), 1.0, 0.005, command, velocity, velocity, up, np.array([0.006]), 0.2, 0.3, 0.1
     )
 
 
@@ -46,7 +46,7 @@ def test_gains_are_corrected_by_the_share_of_the_speed_that_was_reached_in_each_
     command = np.repeat(COMMANDS, 2, axis=0)
     shares = np.where(command[:, :1] < 0, 0.8, 1.25) * np.ones(3)
     shares[:, 1], shares[:, 2] = 0.9, 0.7
-    trot = Trot(gain=1.0, turn_gain=1.0)
+    trot = Trot(gain=1.0, back_gain=1.0, side_gain=1.0, turn_gain=1.0)
     found = first_gait._corrected(trot, walked(command, shares))
     assert found.gain == pytest.approx(1 / 1.25)
     assert found.gain * found.back_gain == pytest.approx(1 / 0.8)
@@ -108,8 +108,6 @@ def test_a_task_of_slower_commands_is_judged_by_slower_walks_with_the_same_relat
 def test_a_trot_is_fitted_to_servos_of_two_thirds_of_the_stiffness_and_torque(monkeypatch):
     monkeypatch.setattr(first_gait, "_CANDIDATES", 24)
     monkeypatch.setattr(first_gait, "_GENERATIONS", 2)
-    monkeypatch.setattr(first_gait, "_SECONDS", 3.0)
-    monkeypatch.setattr(first_gait, "_EACH", 1)
     servos = servo_ranges(CALIBRATION)
     factors = {"stiffness": 0.65, "effort_limit": 0.8}
 
@@ -123,11 +121,11 @@ def test_a_trot_is_fitted_to_servos_of_two_thirds_of_the_stiffness_and_torque(mo
     shares = []
     found = fit_trot(preset("fast", "mlp").task, weak, 0, progress=shares.append)
     before, after = found.before, found.after
-    # 7 of 100 % of the speed before. Their friction is more than half of their torque, so that feet
+    # 35 % of the speed before. Their friction is more than half of their torque, so that feet
     # that keep up with the speed are not lifted as high as on other servos: the limit is named
     low, high = first_gait.FORWARD
     assert before.poor and low <= after.forward_share <= high
-    assert after.score > before.score + 0.15
+    assert before.forward_share < 0.6 and after.score > before.score + 0.05
     assert after.poor and found.limit in ("torque", "friction")
     assert shares == sorted(shares) and shares[-1] == 1.0
 
@@ -161,8 +159,7 @@ def test_a_teacher_from_nothing_has_the_rhythm_and_the_stance_of_the_fitted_trot
     run = preset("fast", "mlp", "scratch")
     found = suited(run, FirstGait(before=BAD, trot=FITTED, after=GOOD, limit=None))
     rewards = teacher_of(found).task.rewards
-    assert rewards.clock_hz == pytest.approx(3.6 * 2.5 / 3.58)
-    assert rewards.clock_duty < run.task.rewards.clock_duty
+    assert (rewards.clock_hz, rewards.clock_duty) == (2.5, 0.7)
     assert (rewards.crouch, rewards.spread) == (0.01, 0.002)
     # and where nothing was fitted, those that it always had
     usual = teacher_of(run).task.rewards
@@ -193,7 +190,7 @@ def test_a_poor_gait_is_searched_where_there_is_time_and_the_user_reads_why(monk
         (GOOD, tiny_run(first_gait="fit"), True, "2.5 Hz, duty 0.70, lift 20 mm"),
         (replace(GOOD, forward_share=0.85), tiny_run(), True, "Searching"),
         (replace(GOOD, forward_share=1.2), tiny_run(), True, "Searching"),
-        (replace(GOOD, low_swing_share=0.4), tiny_run(), True, "Searching"),
+        (replace(GOOD, clearance_p10_m=0.004), tiny_run(), True, "Searching"),
     )
     for judged, run, searched, sentence in cases:
         own[:], said = [judged], list[str]()

@@ -108,5 +108,10 @@ def test_missing_settings_take_their_defaults_and_older_ones_are_passed_over(tmp
         "   delay: {first: 0.5}\n   push: {first: 0.0, begin: 1.5, end: 5.0}"
     )
     assert load_run(tmp_path).task.curriculum == Curriculum(push=(0.0, 1.0, 1.5, 5.0))
+    (tmp_path / RUN_FILE).write_text(
+        "schema: pupper-run\nschema_version: 2\nsettings: {task: {trot: {lift_m: 0.011}}}"
+    )
+    trot = load_run(tmp_path).task.trot
+    assert (trot.back_gain, trot.side_gain) == (1.0, 1.0), "as it was trained"
     (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 4\nsettings: {}")
     assert_each_refused([(tmp_path, "Upgrade pupper-sysid")], load_run, names="newer version")

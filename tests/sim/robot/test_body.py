@@ -91,8 +91,9 @@ def test_the_mini_puppers_own_file_makes_the_same_body(tmp_path):
     np.testing.assert_allclose(read.feet_in_trunk(joints), own.feet_in_trunk(joints), atol=1e-9)
     phase = np.linspace(0, 6, 9)
     command = np.tile([0.1, 0.02, 0.1], (9, 1))
+    trot = Trot(lift_m=0.008)  # within the calves' range, at whose end a file's legs stop
     np.testing.assert_allclose(
-        Trot().joints(phase, command, read), Trot().joints(phase, command, own), atol=1e-6
+        trot.joints(phase, command, read), trot.joints(phase, command, own), atol=1e-6
     )
 
 
