@@ -79,6 +79,9 @@ class Part(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
+    def __str__(self) -> str:  # pydantic's lists every field, of what has a short repr, too
+        return repr(self)
+
 
 def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> bytes:
     """Content of a regular file of limited size; a larger one is refused without being read.

@@ -44,6 +44,7 @@ def test_representations_are_short_and_have_units(hip):
     calibration = ps.load_calibration("data/samples/calibrated.yaml")
     first, hip_line, *others = repr(calibration).splitlines()
     assert first == "Calibration of Mini Pupper 2 (emulated)" and len(others) == 2
+    assert str(calibration) == repr(calibration), "what print shows"
     dead_time = calibration.joints["LF_hip"].actuator.dead_time_s
     assert f"dead time {1e3 * dead_time.value:.1f} " in hip_line and " N·m/rad" in hip_line
     assert repr(ps.Interval(0.041234567, 0.04, 0.0425)) == "Interval(0.04123, 0.04…0.0425)"
