@@ -102,8 +102,8 @@ class PreparedJoint:
     load_notes : tuple of str
         What the recordings say against the claimed load, in sentences.
     between_rad : tuple of ndarray
-        Of several recordings, by how far the readings of each run differ for it (see
-        `between_recordings`); empty of one.
+        Of each run, by how far its readings differ from those of the mean servo because of its
+        recording (`between_recordings`) [rad]; empty of one recording.
     """
 
     joint: str
@@ -149,10 +149,11 @@ class PreparedJoint:
         return fit_apart(problem, fit.point, self.least_rad, self.quantum_rad)
 
     def alike_by(self, structure: Structure, fit: Fit) -> tuple[PreparedJoint, Fit]:
-        """The joint with its recordings as `alike` as fits to each say, and that of their mean.
+        """The joint with the differences of its recordings by fits to each, and their mean servo.
 
-        The joint itself and `fit`, to all recordings, where there is one, and where the structure
-        does not describe each: numbers of their own would make up for what it lacks.
+        `fit`: to all recordings as they were read. The joint itself and `fit` are returned where
+        there is one recording, and where the structure does not describe each of them: numbers of
+        each would make up for what it lacks.
         """
         apart = self.apart(structure, fit)
         if not apart or any(one.misfit > DESCRIBED for one in apart.values()):

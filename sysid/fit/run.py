@@ -28,7 +28,8 @@ fits where longer ones would move a number."""
 _LEAST_AT_REST, _SETTLES, _FAR = 8, 3.0, 5.0
 """Readings whose halves can be compared, and the difference [standard errors] of a moving joint."""
 _DENSE_S = 0.008
-"""Readings of a search that is twice as dense are thinned to one in this time [s]."""
+"""Time within which a servo hardly moves [s]: a search takes one reading in it, where there are
+twice as many or more."""
 _PERIODS = 2.0
 """Of a tone that a search sees at least: those after the first are alike."""
 _PART_S, _SETTLED_S, _LONG, _STILL = 3.0, 0.6, 1.5, 0.1
@@ -169,7 +170,7 @@ class Run:
         )
 
     def _thinned(self) -> Run:
-        """The run without the most of readings that are closer than a servo moves."""
+        """The run with one reading in `_DENSE_S`, if that leaves at most half of them."""
         apart = np.floor(self.sample_step * (self.step_s / _DENSE_S))
         use = np.unique(apart, return_index=True)[1]
         return self if len(use) > len(apart) // 2 else self._part(0, use)

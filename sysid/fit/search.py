@@ -69,7 +69,8 @@ class Problem:
     noise_rad : tuple of float
         Of each run: the soft-L1 loss bends here, the prior is weighed against it.
     recordings : int
-        Which had numbers of their own taken from their readings, those of all included.
+        How many have had their differences taken from their readings; each cost as many numbers
+        as the structure has.
     whole : bool
         Whether the runs have all of their readings.
     """
