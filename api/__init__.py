@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.doctor.examination import examine as doctor
     from pupper_sysid.sysid.doctor.examination import examine as examine
     from pupper_sysid.sysid.fit.calibrate import calibrate
-    from pupper_sysid.sysid.fit.dead_time import lag as delay
-    from pupper_sysid.sysid.fit.dead_time import lag as lag
+    from pupper_sysid.sysid.fit.calibrate import lag as delay
+    from pupper_sysid.sysid.fit.calibrate import lag as lag
     from pupper_sysid.sysid.lag.frequency_response import frequency_response as bode
     from pupper_sysid.sysid.lag.frequency_response import frequency_response as frequency_response
     from pupper_sysid.sysid.recordings.files import load
@@ -52,7 +52,7 @@ _MODULES = {
     "load": "sysid.recordings.files",
     "Recording": "sysid.recordings.recording",
     "doctor": "sysid.doctor.examination:examine",
-    "delay": "sysid.fit.dead_time:lag",
+    "delay": "sysid.fit.calibrate:lag",
     "bode": "sysid.lag.frequency_response:frequency_response",
     "backlash": "sysid.backlash",
     "calibrate": "sysid.fit.calibrate",

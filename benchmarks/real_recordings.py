@@ -28,6 +28,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
 from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.compare.compare import calibrated_run, compare
@@ -121,7 +122,7 @@ def sweep(seed: int) -> None:
 
 def rows_error(tracks: scores.Tracks, data: ServoData) -> dict[str, float]:
     """RMS of all rows as logged against the predicted readings, by joint [rad]."""
-    return {j: scores.rms(e.raw) for j, e in scores.errors(None, tracks, data, everything).items()}
+    return {j: rms(e.raw) for j, e in scores.errors(None, tracks, data, everything).items()}
 
 
 def by_rule(

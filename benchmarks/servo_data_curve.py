@@ -22,6 +22,7 @@ import pandas as pd
 import tyro
 
 from pupper_sysid.common.joints import DEFAULT_POSE
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.delayed_pd import ServoModel
 from pupper_sysid.servo_models.servo_file import physical_model
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -114,7 +115,7 @@ def main(seed: int = 0, csv: Path | None = None, sizes: tuple[int, ...] = SIZES)
             fit = fitted_model(arch, preset, data, first, seed)
             seconds = time.perf_counter() - started
             errors = scores.errors(fit, scores.tracks(fit, data), data, unseen)
-            error = float(np.mean([scores.rms(e.free_run) for e in errors.values()]))
+            error = float(np.mean([rms(e.free_run) for e in errors.values()]))
             rows.append(
                 {"model": _key(arch, preset), "samples_per_joint": size,
                  "rmse_free_run_rad": error, "fit_s": round(seconds, 1)}

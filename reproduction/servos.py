@@ -10,7 +10,7 @@ import numpy as np
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.compare.compare import FITTED, PUBLISHED, Comparison, four_way
 from pupper_sysid.sysid.doctor.examination import JointExamination, examine
-from pupper_sysid.sysid.fit.dead_time import lag
+from pupper_sysid.sysid.fit.calibrate import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
 from reproduction.evidence import Claim, Finding, NotTestable, claim, holds, span

@@ -33,6 +33,7 @@ from pupper_sysid.common.files import hold_output, sha256, write_text
 from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.processes.workers import Workers
 from pupper_sysid.common.reading.content import read_limit, reading_up_to
+from pupper_sysid.common.signals import robust_sd
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
@@ -232,8 +233,8 @@ def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
         for key in quantities:
             values = table.loc[rows, key].to_numpy(float)
             middle = np.nanmedian(values)
-            # 1.4826 makes the median deviation that of a normal distribution
-            spread = 1.4826 * np.nanmedian(np.abs(values - middle))
+            apart = values - middle
+            spread = robust_sd(apart[np.isfinite(apart)])
             if not spread > 1e-9 * max(abs(middle), 1e-12):
                 continue
             for row, value in zip(rows, values, strict=True):

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
 from pupper_sysid.common.results import JointResults, Result, derived
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.kernel import SPARSE
 from pupper_sysid.servo_models.sparse_equation import (
@@ -447,8 +448,8 @@ def _regress(trials: Sequence[tuple[NDArray, NDArray, NDArray]], limit: float) -
         return lambda v, e: function(v, e) / by
 
     error, speed, acceleration = (np.concatenate(parts) for parts in zip(*trials, strict=True))
-    scale = {n: max(float(np.sqrt(np.mean(f(speed, error) ** 2))), 1e-9) for n, f in terms.items()}
-    unit = max(float(np.sqrt(np.mean(acceleration**2))), 1e-9)
+    scale = {n: max(rms(f(speed, error)), 1e-9) for n, f in terms.items()}
+    unit = max(rms(acceleration), 1e-9)
     supports = set()
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")

@@ -30,11 +30,12 @@ from exchange import Trial as PeerTrial
 from numpy.typing import NDArray
 from random_robots import SweptRobot, sweep_random_robot
 
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
-from pupper_sysid.sysid.fit.scores import Scores, rms, score
+from pupper_sysid.sysid.fit.scores import Scores, score
 from pupper_sysid.sysid.fit.search import folds_of
 from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.files import load
@@ -130,7 +131,7 @@ def off_truth(tracks: list[NDArray], case: Case) -> float:
         return float("nan")
     lengths = map(min, map(len, tracks), map(len, case.motion))
     pairs = zip(tracks, case.motion, lengths, strict=True)
-    return rms([track[:n] - true[:n] for track, true, n in pairs])
+    return rms(*(track[:n] - true[:n] for track, true, n in pairs))
 
 
 def peer_trials(case: Case, data: tuple[Run, ...], retimed: bool) -> list[PeerTrial]:

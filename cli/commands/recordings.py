@@ -65,7 +65,7 @@ class Delay(OfRecordings):
 
     def run(self) -> None:
         """Measure and print."""
-        from pupper_sysid.sysid.fit.dead_time import lag
+        from pupper_sysid.sysid.fit.calibrate import lag
 
         recordings, joints = self.load()
         with terminal.progress("measuring", len(joints)) as advance:

@@ -23,6 +23,7 @@ from scipy.signal import fftconvolve, lfilter
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import UNKNOWN, Interval, mean_of, t_quantile
 from pupper_sysid.common.results import Result
+from pupper_sysid.common.signals import rms
 from pupper_sysid.common.tones import fit_sine, least_squares, sine_design
 from pupper_sysid.policies.walks.rollouts import Rollout
 
@@ -347,7 +348,7 @@ def jitter(signal: Signal) -> float:
     A sine of amplitude A and frequency f has 2√2 A sin²(πf · step): compare gaits of like
     frequency and amplitude only, or look at `fast_share`.
     """
-    return float(np.sqrt(np.mean(np.diff(np.asarray(signal, float), 2, axis=0) ** 2)))
+    return rms(np.diff(np.asarray(signal, float), 2, axis=0))
 
 
 def fast_share(signal: Signal, step_s: float, frequency_hz: float) -> float:

@@ -33,6 +33,7 @@ from pupper_sysid.common.joints import share_sentences
 from pupper_sysid.common.reading.content import content
 from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.common.results import Result, internal
+from pupper_sysid.common.signals import rms
 from pupper_sysid.policies.twin.drawing import Actuator, stronger
 from pupper_sysid.policies.twin.playing import (
     STRONGER,
@@ -284,8 +285,8 @@ def _condition(played: Played, data: ServoData, test: Part, rest: Part, seed: in
     errors = scores.errors(None, tracks, data, test)
     joints = {
         joint: TwinErrors(
-            mae_rad=float(np.mean(np.abs(e.free_run))), rmse_rad=scores.rms(e.free_run),
-            rmse_raw_rad=scores.rms(e.raw), offset_rad=zero[joint],
+            mae_rad=float(np.mean(np.abs(e.free_run))), rmse_rad=rms(e.free_run),
+            rmse_raw_rad=rms(e.raw), offset_rad=zero[joint],
         )
         for joint, e in errors.items()
     }  # fmt: skip

@@ -11,6 +11,7 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, derived
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.parts import (
     ARMATURES,
@@ -229,7 +230,7 @@ def motion_of(first: Servo, second: Servo) -> Motion:
         model = DelayedPD(parameters)
         model.reset(np.zeros(len(tones)))
         moved.append(model.rollout(tones.T))
-    apart = float(np.sqrt(np.mean((moved[0] - moved[1]) ** 2)))
+    apart = rms(moved[0] - moved[1])
     return Motion(lags[0], lags[1], apart if np.isfinite(apart) else None)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import JointResults, Result
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayLine
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
@@ -165,7 +166,7 @@ def _fitted_motion(joint: JointCalibration, commands: NDArray) -> tuple[Array, A
 def _rms_difference(at: NDArray, moved: NDArray, other_at: NDArray, other: NDArray) -> float:
     """RMS difference of two motions, after they have settled [rad]."""
     late = at > _SETTLE_S
-    return float(np.sqrt(np.mean((moved - np.interp(at, other_at, other))[late] ** 2)))
+    return rms((moved - np.interp(at, other_at, other))[late])
 
 
 def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator[str]:
@@ -283,7 +284,7 @@ def _rms_counts(
     """RMS difference of readings in counts: stepped on the export, polled on the calibration."""
     period, quantum = feedback.poll_period_s, feedback.quantum_rad or 2 * np.pi / 4096
     if period <= 0:
-        return float(np.sqrt(np.mean((exported - np.interp(at, fitted_at, fitted)) ** 2)) / quantum)
+        return rms(exported - np.interp(at, fitted_at, fitted)) / quantum
     without_loss = HeldFeedback(poll_period_s=period, quantum_rad=quantum)
     without_loss.reset(exported[0], float(at[1] - at[0]), until_poll_s=period / 2)
     exported_readings = np.array([without_loss.step(x) for x in exported])
@@ -291,4 +292,4 @@ def _rms_counts(
     reported = np.round(np.interp(polls, fitted_at, fitted) / quantum) * quantum
     last_poll = np.clip(np.searchsorted(polls, at + 1e-12, side="right") - 1, 0, None)
     errors = (exported_readings - reported[last_poll])[at > _SETTLE_S] / quantum
-    return float(np.sqrt(np.mean(errors**2)))
+    return rms(errors)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from pupper_sysid.common.signals import robust_sd
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.changes import Followed
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
@@ -275,7 +276,7 @@ def _autoregression(rest: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.floa
     for _ in range(4):
         weights = least_squares(design * weight[:, None], wanted * weight)
         innovations = wanted - design @ weights
-        usual = 1.4826 * float(np.median(np.abs(innovations))) + 1e-12
+        usual = robust_sd(innovations) + 1e-12
         weight = np.sqrt(1 / np.maximum(1, np.abs(innovations) / (2 * usual)))
     return weights, innovations
 
@@ -293,7 +294,7 @@ def _noise(innovations: NDArray[np.float64], step: float, *causes: NDArray) -> N
     for _ in range(3):
         weighted = design / spread[:, None]
         spread = np.maximum(design @ nnls(weighted, size / spread)[0], 0.3 * usual)
-    return spread * 1.4826 * float(np.median(np.abs(innovations) / spread))
+    return spread * robust_sd(innovations / spread)
 
 
 def scatter_findings(tones: Sequence[Trial], lattice: PollLattice) -> list[Finding]:

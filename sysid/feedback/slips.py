@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import Result, internal
+from pupper_sysid.common.signals import robust_sd
 from pupper_sysid.sysid.feedback.poll_search import (
     DRIFT,
     LOCK,
@@ -212,7 +213,7 @@ def _scored(
 
 def robust_scale(residual: NDArray[np.float64], quantum_rad: float) -> float:
     """Scale of a tone's residuals [rad]: of the bulk, at least a quantisation step."""
-    bulk = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
+    bulk = robust_sd(residual)
     return max(bulk, quantum_rad, _SMALLEST_SCALE_RAD)
 
 
@@ -416,7 +417,7 @@ def find_lost_commands(
     lost_commands: list[LostCommands] = []
     rest = simulate(trial.command_rad, len(time_s))
     # a lost command is part of the tone's noise, unless that is taken from the bulk
-    bulk = 1.4826 * float(np.median(np.abs(rest))) if len(rest) else 0.0
+    bulk = robust_sd(rest)
     scale_rad = float(np.clip(bulk, _LEAST_BULK * scale_rad, scale_rad))
     rest = rest / scale_rad
     unexplained = np.ones(len(rest), bool)

@@ -1,7 +1,8 @@
-"""Calibrate the servos of a robot: `calibrate`, from recordings to a calibration file.
+"""Calibrate the servos of a robot, from recordings to a file; or measure their lag alone.
 
     calibrated = calibrate(load("sweep.csv"))
     calibrated.save("calibrated.yaml")
+    lags = lag(load("sweep.csv"))
 
 Each joint is fitted by `sysid.fit.joint_fit`; `sysid.fit.calibration_file` turns the fits
 into the `Calibration` that simulators read.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,11 +26,12 @@ from pupper_sysid.sysid.doctor.checks import (
     Recordings,
     as_sequence,
     chosen_joints,
+    each_joint,
     usable_trials,
 )
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.fit.choice import Fitted, fit_structures, stages
-from pupper_sysid.sysid.fit.joint_fit import Presets, conclude
+from pupper_sysid.sysid.fit.joint_fit import Presets, conclude, joint_lag
 from pupper_sysid.sysid.fit.operating_point import (
     loaded_joints,
     reference_gain,
@@ -38,6 +41,7 @@ from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior, servo_prior
 from pupper_sysid.sysid.fit.structure import SIMULATED
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:
@@ -240,3 +244,57 @@ def side_by_side(
                     fits = {name: fits[name] for name in stages(ready[joint])}
                     pool.submit((joint, CHOICE), conclude, ready[joint], fits, presets)
     return {joint: results[joint] for joint in trials}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LagBudgets(JointResults[LagBudget]):
+    """Lag budgets by joint."""
+
+    def plot(self) -> Figure:
+        """One stacked bar per joint."""
+        from pupper_sysid.sysid.report.figures import lag_budget_figure
+
+        return lag_budget_figure(self)
+
+
+def lag(
+    recordings: Recordings,
+    joints: Joints = None,
+    seed: int = 0,
+    workers: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> LagBudgets:
+    """Measure the lag of every joint: stale readings, command hold, dead time and dynamics.
+
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+        Trials of one joint are pooled.
+    joints : str or sequence of str, optional
+        Which joints; by default all that were recorded.
+    seed : int
+        Of the bootstrap and of the model's global start.
+    workers : int
+        Processes.
+    progress : callable, optional
+        Called with a joint's name when it is done.
+
+    Returns
+    -------
+    LagBudgets
+        Lag budget by joint.
+
+    Raises
+    ------
+    InputError
+        If a joint has too little motion.
+
+    Examples
+    --------
+    >>> from pupper_sysid.sysid.recordings.files import load
+    >>> found = lag(load("data/samples/sweep.csv"), "LF_hip")  # doctest: +SKIP
+    >>> found["LF_hip"].dead_time_s  # doctest: +SKIP
+    Interval(value=0.0249, low=0.0233, high=0.0263)
+    """
+    work = partial(joint_lag, seed=seed)
+    return LagBudgets(joints=each_joint(work, recordings, joints, workers, progress))

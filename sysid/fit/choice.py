@@ -22,10 +22,16 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models import kernel
-from pupper_sysid.sysid.fit.goodness import DESCRIBED, DESCRIBED_ONE, goodness_of_fit, overall
+from pupper_sysid.sysid.fit.goodness import (
+    DESCRIBED,
+    DESCRIBED_ONE,
+    goodness_of_fit,
+    noise_by_run,
+    overall,
+)
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, with_delays
-from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     FEW_ROUNDS,
     LEAST_FOLDS,
@@ -42,7 +48,7 @@ from pupper_sysid.sysid.fit.results import (
     plausible,
 )
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
-from pupper_sysid.sysid.fit.scores import held_out_residuals, rms
+from pupper_sysid.sysid.fit.scores import held_out_residuals
 from pupper_sysid.sysid.fit.search import (
     LEAVES_MOTION,
     Fit,
@@ -435,7 +441,7 @@ def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
     runs = ready.alike
     folds = folds_of(runs)
     left_out = held_out_residuals(fitted.structure, fitted.folds or [], folds, runs)
-    return rms(list(left_out.values()))
+    return rms(*left_out.values())
 
 
 def _dead_time(ready: PreparedJoint, exported: Fitted, likely: Sequence[Fitted]) -> Interval:
@@ -723,7 +729,7 @@ def _misfit(goodness: Mapping[str, float]) -> float:
 
 def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
     """RMS error on fresh readings [rad]."""
-    return rms(fresh_residuals(fitted.structure, fitted.values, ready.alike))
+    return rms(*fresh_residuals(fitted.structure, fitted.values, ready.alike))
 
 
 def undescribed(goodness: Mapping[str, float]) -> str | None:

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.signals import rms
 from pupper_sysid.sysid.fit import search
-from pupper_sysid.sysid.fit.noise import noise_by_run
+from pupper_sysid.sysid.fit.goodness import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import loads_in_words
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit, Problem, temperature_at
@@ -226,7 +227,7 @@ def _data_cost(problem: Problem, fit: Fit) -> float:
 def _rms(problem: Problem, fit: Fit) -> float:
     """RMS error of the readings [rad]."""
     noise = np.repeat(problem.noise_rad, [len(r.sample_step) for r in problem.runs])
-    return float(np.sqrt(np.mean((problem.scaled(fit.point[None])[0] * noise) ** 2)))
+    return rms(problem.scaled(fit.point[None])[0] * noise)
 
 
 def _words(plausible: Structure) -> str:

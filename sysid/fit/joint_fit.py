@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
@@ -33,8 +34,7 @@ from pupper_sysid.sysid.fit.choice import (
     stages,
     undescribed,
 )
-from pupper_sysid.sysid.fit.goodness import DESCRIBED, overall
-from pupper_sysid.sysid.fit.noise import command_jitter
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, command_jitter, overall
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
     HARDLY_CONVERGED,
@@ -52,7 +52,7 @@ from pupper_sysid.sysid.fit.results import (
     StructureFit,
 )
 from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals
-from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, rms, score
+from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, score
 from pupper_sysid.sysid.fit.search import (
     curvature,
     fit_folds,
@@ -164,7 +164,7 @@ def _in_free_air(
             fitted = Fitted(structure, fits[0])
         # a model that errs more on what it was fitted to cannot be better on unseen tones
         residuals = fresh_residuals(structure, fitted.values, runs)
-        if rms(residuals) <= min(least):
+        if rms(*residuals) <= min(least):
             near = fitted.fit.point + _spread(ready, fitted) * rng.standard_normal(
                 (_NEAR, len(structure.parameters))
             )
@@ -279,7 +279,7 @@ def _lag(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, float]) ->
     if dead is None:
         return choice.lag
     tracks = free_run(choice.exported.structure, choice.exported.values, ready.runs)
-    speed = rms([np.gradient(t) / r.step_s for t, r in zip(tracks, ready.runs, strict=True)])
+    speed = rms(*(np.gradient(t) / r.step_s for t, r in zip(tracks, ready.runs, strict=True)))
     hidden = _hidden_rad(ready, choice, goodness) / max(speed, 1e-9)
     wide = _as_wide_as_misfit(dead, goodness, hidden)
     if np.isfinite(lag_s.high):  # the dynamics lag, too
@@ -295,7 +295,7 @@ def _hidden_rad(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, flo
     """RMS error that is not noise [rad]: a motion in a wrong shape can hide as much."""
     if not undescribed(goodness):
         return 0.0
-    error = rms(fresh_residuals(choice.exported.structure, choice.exported.values, ready.alike))
+    error = rms(*fresh_residuals(choice.exported.structure, choice.exported.values, ready.alike))
     return float(error * np.sqrt(1.0 - overall(goodness) ** -2))
 
 
@@ -820,7 +820,7 @@ def _summary(fitted: Fitted, runs: Sequence[Run], choice: Choice) -> StructureFi
         name=structure.name,
         parameters={n: float(v) for n, v in zip(structure.names, values, strict=True)},
         mae_rad=float(np.mean([np.mean(np.abs(r)) for r in parts])),
-        rmse_rad=rms(parts),
+        rmse_rad=rms(*parts),
         mae_unseen_rad=float(np.mean(unseen)) if unseen else float("nan"),
         nats=choice.nats[structure.name],
     )

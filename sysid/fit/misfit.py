@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from pupper_sysid.common import filters
 from pupper_sysid.common.interval import LEVEL
+from pupper_sysid.common.signals import filtered
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import (
@@ -246,15 +246,13 @@ def _end(problem: Problem, fit: Fit, temperature: float, room: float, way: float
     return delay
 
 
-def filtered(run: Run, time_constant_s: float) -> Run:
+def low_passed(run: Run, time_constant_s: float) -> Run:
     """The run with its command behind a first-order low-pass filter, at rest before."""
     ratio = time_constant_s / run.step_s
     decay = np.exp(-1.0 / ratio)
     command = run.held[0]
     rest = command[0]
-    end = rest + filters.filtered(
-        np.array([1.0 - decay, 0.0]), np.array([1.0, -decay]), command - rest
-    )
+    end = rest + filtered(np.array([1.0 - decay, 0.0]), np.array([1.0, -decay]), command - rest)
     before = np.concatenate([[rest], end[:-1]])
     mean = command + (before - command) * ratio * (1.0 - decay)
     held = np.concatenate([mean[None], run.held[1:]])
@@ -323,7 +321,7 @@ def _unlikely(problem: Problem, fit: Fit) -> float:
 
 def _behind(problem: Problem, time_constant_s: float) -> Problem:
     """The same fit with the commands behind a filter."""
-    return replace(problem, runs=tuple(filtered(r, time_constant_s) for r in problem.runs))
+    return replace(problem, runs=tuple(low_passed(r, time_constant_s) for r in problem.runs))
 
 
 def _earlier(structure: Structure, point: NDArray, time_constant_s: float) -> NDArray[np.float64]:

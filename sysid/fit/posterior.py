@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.run import with_late_commands
-from pupper_sysid.sysid.fit.scores import rms
 from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, jacobians, local
 from pupper_sysid.sysid.fit.structure import Structure
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -395,7 +395,7 @@ def with_date_errors(
 
     moved = off([LATCH_SD_S] * len(runs), 0.0)
     latch_s = [
-        LATCH_SD_S * min(1.0, rms([noise]) / max(rms([of_latch]), 1e-12))
+        LATCH_SD_S * min(1.0, rms(noise) / max(rms(of_latch), 1e-12))
         for noise, of_latch in zip(np.split(plain, ends), np.split(moved, ends), strict=True)
     ]
     errors = np.array([off(latch_s, PHASE_SD_S if polled else 0.0) for _ in range(_DATE_DRAWS)])

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
@@ -331,8 +332,7 @@ def track_of(
 
 def persistence(runs: Sequence[ComparedRun]) -> float:
     """RMS of the readings' moves [rad]."""
-    moves = np.concatenate([np.diff(compared.run.sample_rad) for compared in runs])
-    return float(np.sqrt(np.mean(moves**2))) if len(moves) else float("nan")
+    return rms(*(np.diff(compared.run.sample_rad) for compared in runs))
 
 
 def notes(

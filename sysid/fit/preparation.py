@@ -32,8 +32,13 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.slips import LostCommands, Motion, find_lost_commands
 from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
-from pupper_sysid.sysid.fit.goodness import DESCRIBED, LEAST_NOISE_RAD, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.noise import noise_by_run
+from pupper_sysid.sysid.fit.goodness import (
+    DESCRIBED,
+    LEAST_NOISE_RAD,
+    goodness_of_fit,
+    noise_by_run,
+    overall,
+)
 from pupper_sysid.sysid.fit.operating_point import loaded_joints, reference_gain
 from pupper_sysid.sysid.fit.posterior import STEPPING_SD_S, STEPPING_SHARE
 from pupper_sysid.sysid.fit.repeats import (

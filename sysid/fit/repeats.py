@@ -18,8 +18,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.calibration.quantity import words_of
-from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.noise import noise_by_run, temperature_of
+from pupper_sysid.sysid.fit.goodness import (
+    DESCRIBED,
+    goodness_of_fit,
+    noise_by_run,
+    overall,
+    temperature_of,
+)
 from pupper_sysid.sysid.fit.posterior import Straight
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.search import Problem, curvature, local, refine

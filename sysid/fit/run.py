@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, Readings, readings
@@ -284,7 +285,7 @@ def _rest_rad(trial: Trial) -> float:
     beside = rest[:1], rest, rest[-1:]
     around = np.lib.stride_tricks.sliding_window_view(np.concatenate(beside), 3)
     away = np.abs(rest - np.median(around, axis=1))
-    usual = float(np.sqrt(np.mean(np.sort(away)[:-1] ** 2)))
+    usual = rms(np.sort(away)[:-1])
     rest = rest[away <= _FAR * max(usual, 1e-9)]
     early, late = np.array_split(rest, 2)
     error = np.std(late) / np.sqrt(len(late))

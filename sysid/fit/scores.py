@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import Result
+from pupper_sysid.common.signals import rms
 from pupper_sysid.sysid.fit.run import Run, at_steps, fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit
 from pupper_sysid.sysid.fit.structure import Structure
@@ -78,15 +79,15 @@ def score(
         if len(run.sample_rad):
             spread.append(run.sample_rad - run.sample_rad.mean())
     left_out = dict(held_out or {})
-    unseen, tones = rms(list(left_out.values())), all(_is_number(name) for name in left_out)
+    unseen, tones = rms(*left_out.values()), all(_is_number(name) for name in left_out)
     return Scores(
-        rmse_fresh_rad=rms(fresh),
-        rmse_held_rad=rms(held),
-        rmse_raw_rad=rms(raw),
-        rmse_one_step_rad=rms(one_step),
+        rmse_fresh_rad=rms(*fresh),
+        rmse_held_rad=rms(*held),
+        rmse_raw_rad=rms(*raw),
+        rmse_one_step_rad=rms(*one_step),
         rmse_leave_one_frequency_out_rad=unseen if tones else float("nan"),
-        rmse_by_left_out_frequency_rad={n: rms([r]) for n, r in left_out.items()} if tones else {},
-        fit_percent=100.0 * (1.0 - rms(fresh) / max(rms(spread), 1e-9)),
+        rmse_by_left_out_frequency_rad={n: rms(r) for n, r in left_out.items()} if tones else {},
+        fit_percent=100.0 * (1.0 - rms(*fresh) / max(rms(*spread), 1e-9)),
         rmse_unseen_runs_rad=float("nan") if tones else unseen,
     )
 
@@ -110,12 +111,6 @@ def held_out_residuals(
         )
         for (name, out), fit in zip(folds.items(), fits, strict=True)
     }  # fmt: skip
-
-
-def rms(parts: Sequence[NDArray]) -> float:
-    """Root mean square of all numbers of all parts; NaN if there are none."""
-    every = np.concatenate([np.empty(0), *parts])
-    return float(np.sqrt(np.mean(every**2))) if len(every) else float("nan")
 
 
 def known(values: NDArray[np.float64]) -> NDArray[np.float64]:

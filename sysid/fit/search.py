@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.fit.noise import temperature_of
+from pupper_sysid.sysid.fit.goodness import temperature_of
 from pupper_sysid.sysid.fit.run import Run, costs, fresh_residuals, moments_if_later, residuals
 from pupper_sysid.sysid.fit.structure import LIMITS, Structure
 

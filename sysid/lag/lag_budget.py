@@ -43,6 +43,7 @@ from scipy.special import stdtrit
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, flat
+from pupper_sysid.common.signals import rms
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.doctor.writers import scatter_findings
 from pupper_sysid.sysid.feedback.poll_lattice import (
@@ -238,7 +239,7 @@ def lag_budget(
                 replace(a, lag_s=_hull(a.lag_s, b.lag_s))
                 for a, b in zip(by_frequency, other.by_frequency(), strict=True)
             )
-    noise = float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else math.nan
+    noise = rms([tone.residual_rad for tone in tones])
     return LagBudget(
         joint=joint, raw_lag_s=raw, fresh_lag_s=fresh, lag_s=lag,
         stale_lag_s=raw.value - fresh.value, command_hold_s=fresh.value - lag.value,

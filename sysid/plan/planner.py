@@ -36,6 +36,7 @@ from scipy.optimize import nnls
 from pupper_sysid.common.border import Part
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
+from pupper_sysid.common.signals import robust_sd
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.servo_models.calibration.quantity import Number
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
@@ -576,7 +577,7 @@ def fitted_noise(
     square, speed = [], []
     for trial, track in zip(trials, free_run(model, values, trials), strict=True):
         off = at_steps(track, trial.sample_step) - trial.sample_rad
-        bound = 4 * 1.4826 * np.median(np.abs(off)) + 1e-12  # a lost command is not the noise
+        bound = 4 * robust_sd(off) + 1e-12  # a lost command is not the noise
         square.append(np.mean(np.clip(off, -bound, bound) ** 2))
         speed.append(np.mean(np.gradient(track) ** 2) / trial.step_s**2)
     rows = np.column_stack([np.ones(len(square)), speed]) / np.maximum(square, 1e-12)[:, None]

@@ -28,6 +28,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.signals import rms, robust_sd
 from pupper_sysid.common.tones import sine_design
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -217,7 +218,7 @@ def _at_rest_from(trial: Trial, first: int, stop: int) -> int:
     last = position[-max(_LEAST_STILL, len(seen) // 4) :]
     # of second differences, which a steady motion leaves at zero; their variance is six times as
     # large
-    noise = 1.4826 * float(np.median(np.abs(np.diff(last, 2)))) / np.sqrt(6.0)
+    noise = robust_sd(np.diff(last, 2)) / np.sqrt(6.0)
     span = float(np.ptp(every))
     near = max(4.0 * noise, 1.01 * quantum, _STILL * span)
     (moving,) = np.nonzero(np.abs(position - np.median(last)) > near)
@@ -371,7 +372,7 @@ def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> 
         first = earlier
     # the first rows of what follows may be close to the sine by chance
     rest = np.abs(fit.residual(first, last + 1))
-    close = rest <= max(_CLOSE * fit.amplitude, 4 * float(np.sqrt(np.mean(rest**2))))
+    close = rest <= max(_CLOSE * fit.amplitude, 4 * rms(rest))
     first, last = first + int(np.argmax(close)), last - int(np.argmax(close[::-1]))
     fit = _Sine.of(clock, command, first, last + 1, fit.frequency)
     if fit is None or clock[last] - clock[first] < _LEAST_PERIODS / fit.frequency:

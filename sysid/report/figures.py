@@ -35,6 +35,7 @@ from pupper_sysid.common.figure_style import (
     styled,
 )
 from pupper_sysid.common.interval import HALF_WIDTH_SD
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.backlash import JointBacklash
@@ -534,7 +535,7 @@ def free_run_figure(
             track = model_tracks[joint][index]
             track = track[:: scores.steps_per_tick(track, run)]
             colour = _COLOURS[n % len(_COLOURS)]
-            error = 1e3 * scores.rms(errors[name][joint].free_run)
+            error = 1e3 * rms(errors[name][joint].free_run)
             label = f"{name}, {error:.1f} mrad"
             axes.plot(
                 time, track[part], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label

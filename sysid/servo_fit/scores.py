@@ -26,6 +26,7 @@ from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import internal
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, AtControlRate, ServoModel
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.fit.predict import ReadingRule, ages
@@ -218,12 +219,6 @@ def _joined(parts: Sequence[Errors]) -> Errors:
         for name in ("free_run", "one_step", "speed", "held", "raw")
     }
     return Errors(**arrays, block=[b for p in parts for b in p.block])
-
-
-def rms(values: ArrayLike) -> float:
-    """Root mean square; NaN of nothing."""
-    values = np.asarray(values, float)
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
 def mean_known(values: ArrayLike) -> float:

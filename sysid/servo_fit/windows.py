@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.signals import rms, robust_sd
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up_weights
 
 WINDOW = 48
@@ -285,7 +286,7 @@ class LinearFits:
     scale: NDArray[np.float64]
     """RMS of the residuals the model was fitted to, shape (joints, sets)."""
     spread: NDArray[np.float64]
-    """The same, robust: 1.4826 times their median size, shape (joints, sets)."""
+    """The same of their bulk (`robust_sd`), shape (joints, sets)."""
 
 
 def taps(period_s: float) -> int:
@@ -323,8 +324,8 @@ def fit_linear(
             w, r = _robust(a, data.target[j][use].astype(float), ridge)
             fir[j, n], bias[j, n] = w[:-1] * fade, w[-1]
             residual[j, :, :, n] = data.target[j] - x[j] @ w[:-1] - w[-1]
-            scale[j, n] = max(float(np.sqrt(np.mean(r**2))), 1e-3)
-            spread[j, n] = max(1.4826 * float(np.median(np.abs(r))), 1e-3)
+            scale[j, n] = max(rms(r), 1e-3)
+            spread[j, n] = max(robust_sd(r), 1e-3)
     return LinearFits(fir, bias, residual, scale, spread)
 
 
@@ -344,6 +345,6 @@ def _robust(a: NDArray, y: NDArray, ridge: float) -> tuple[NDArray, NDArray]:
         weighted = a * weight[:, None]
         w = np.linalg.solve(weighted.T @ a + ridge * weight.sum() * penalty, weighted.T @ y)
         r = y - a @ w
-        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
+        sigma = max(robust_sd(r), 1e-6)
         weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(r), 1e-12))
     return w, r

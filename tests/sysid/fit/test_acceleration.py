@@ -9,9 +9,8 @@ from pupper_sysid.servo_models.loaded_servo import LoadedServo, LoadedServoParam
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.doctor.checks import usable_trials
 from pupper_sysid.sysid.fit import choice
-from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.calibrate import calibrate, lag
 from pupper_sysid.sysid.fit.choice import Fitted
-from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.search import Fit
 from pupper_sysid.sysid.fit.structure import servo_structure

@@ -11,7 +11,7 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import undescribed
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.joint_fit import unidentified
-from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered, with_delays
+from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, low_passed, with_delays
 from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, Structure, candidate, servo_structure
@@ -40,7 +40,7 @@ def found(
     time = STEP_S * np.arange(int(2.0 / STEP_S))
     levels = np.repeat(0.3 * rng.standard_normal(8), len(time) // 8)
     runs = (stepped_run(levels), stepped_run(0.3 * np.sin(2 * np.pi * 2.0 * time)))
-    moved = tuple(filtered(r, filter_s) for r in runs) if filter_s else runs
+    moved = tuple(low_passed(r, filter_s) for r in runs) if filter_s else runs
     tracks = free_run(structure, np.array([numbers[n] for n in structure.names]), moved)
     read = tuple(
         replace(r, sample_rad=np.interp(r.sample_step, np.arange(len(t)), t)
@@ -112,7 +112,7 @@ def test_numbers_that_are_unknown_for_one_reason_share_a_sentence():
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
     time = CONTINUOUS_S * np.arange(2000)
-    run = filtered(fine_run(np.where(time < 0.1, 0.0, 1.0)), 0.02)
+    run = low_passed(fine_run(np.where(time < 0.1, 0.0, 1.0)), 0.02)
     end = run.edges[0][run.pad :]
     expected = np.where(time < 0.1, 0.0, 1.0 - np.exp(-(time + CONTINUOUS_S - 0.1) / 0.02))
     np.testing.assert_allclose(end, expected, atol=1e-6)

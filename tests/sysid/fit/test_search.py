@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import Fitted
 from pupper_sysid.sysid.fit.joint_fit import _slight_limits
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
-from pupper_sysid.sysid.fit.scores import rms
 from pupper_sysid.sysid.fit.search import (
     Fit,
     Problem,
@@ -129,7 +129,7 @@ def test_a_search_sees_parts_of_a_long_motion_in_which_the_servo_moves_as_in_the
     steps = [float(np.ptp(r.sample_step)) for r in excerpt.runs]
     assert 11_000 < sum(steps) < 15_000 and max(steps) * excerpt.runs[0].step_s < 3.1
     for residuals in fresh_residuals(structure, truth, excerpt.runs):
-        assert rms([residuals]) < 1.2 * NOISE_RAD
+        assert rms(residuals) < 1.2 * NOISE_RAD
     for whole in (steps_of(15.0, rng), replace(steps_of(2.0, rng), frequency_hz=1.0)):
         short = problem_of(structure, truth, whole, NOISE_RAD, rng)
         assert short.excerpt is short

@@ -15,8 +15,7 @@ from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sysid.fit.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.fit.dead_time import lag
+from pupper_sysid.sysid.fit.calibrate import CalibrationResult, calibrate, lag
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import report

@@ -8,6 +8,7 @@ import pytest
 
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.interval import LEVEL
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.networks import CommandNetwork
 from pupper_sysid.servo_models.servo_file import load_servo_model
@@ -24,7 +25,6 @@ from pupper_sysid.sysid.servo_fit.scores import (
     persistence,
     pooled,
     repeatability,
-    rms,
     tracks,
 )
 from support.saved_servo_models import linear_filter
