@@ -91,6 +91,7 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
 
     A folder that is no log itself stands for all logs in it.
     """
+    from pupper_sysid.servo_models import kernel
     from pupper_sysid.sysid.recordings.files import load, newest_recording
     from pupper_sysid.sysid.recordings.importers.recognise import logs_in
 
@@ -108,6 +109,8 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
         by_name.setdefault(recording.name, []).extend(recording.warnings)
     for names, text in share_sentences(by_name):
         warn(f"{'all logs' if names == 'All joints' else names}: {text}")
+    if not kernel.compiled():
+        err.print("Compiling the simulation, once after an installation: about half a minute.")
     if len(recordings) > 1 and all(recording.joints == ["joint"] for recording in recordings):
         warn("the logs name no joint: they were taken as runs of one. Give those of several joints "
              "names, each with `pupper-sysid import LOG --joints NAME`.")  # fmt: skip

@@ -175,10 +175,10 @@ _KINDS = {
     RECORDING: ("a recording", "`pupper-sysid doctor`, `delay` and `calibrate` read it"),
     _TRUTH: ("the truth of an emulated recording", "`pupper-sysid compare-truth` reads it"),
     "pupper-calibration": (
-        "a calibration", "`pupper-sysid export` reads it, `compare` takes it as one of `models`"),
+        "a calibration", "`pupper-sysid export` reads it, `compare` takes it as --models"),
     "pupper-servo-card": ("a servo card", "`pupper-sysid servo show` and `servo diff` read it"),
     "pupper-servo-model": (
-        "a fitted servo model", "`pupper-sysid compare` takes its folder as one of `models`"),
+        "a fitted servo model", "`pupper-sysid compare` takes its folder as --models"),
     "pupper-sysid plan": ("a plan", "`pupper-sysid sweep` takes it as `plan`"),
     "pupper-policy": ("a policy", "`pupper-eval`, `pupper-play` and `pupper-deploy` read it"),
     "pupper-run": ("a training run", "`pupper-eval` reads its folder, `pupper-train` resumes it"),

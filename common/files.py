@@ -59,7 +59,7 @@ def _refuse_existing(path: Path, force: bool) -> None:
         raise InputError(f"{path} is there and is not a file. Choose another name.")
     if not force:
         raise FileExistsRefusal(
-            f"{path} exists already. Choose another name, or set `force=True` to replace it."
+            f"{path} exists already. Choose another name, or replace it with `force=True`."
         )
 
 

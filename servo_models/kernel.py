@@ -13,6 +13,7 @@ stand beside the servo in tables. Compiled once per machine, on first use, and c
 from __future__ import annotations
 
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -580,6 +581,11 @@ def edges_of(
     apart = before - end
     share = (mean - end) / np.where(apart == 0, 1.0, apart)
     return np.stack([end, np.clip(share, 0.0, 1.0)])
+
+
+def compiled() -> bool:
+    """Whether the simulation has been compiled on this machine; else its first call does it."""
+    return any(Path(_evaluate.stats.cache_path).glob(f"{Path(__file__).stem}._evaluate-*.nbi"))
 
 
 def _order(simulated: Simulated) -> NDArray[np.int64]:

@@ -244,8 +244,8 @@ def _verdict(comparison: compare.Comparison) -> Iterator[str]:
         yield "They agree within 2 % in every number that both state."
     else:
         yield (
-            f"They differ most in {most.quantity}: {most.ratio:.3g} times. Numbers that only one "
-            "states show a dash."
+            f"They differ most in {most.quantity}: {most.ratio:.3g} times. A dash stands "
+            "where only one states a number."
         )
     yield (
         "On tones of 1, 2 and 4 Hz, 0.2 rad: lag {} and {} ms, {} mrad apart (RMS), each as it "

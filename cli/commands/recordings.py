@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import webbrowser
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -84,6 +85,8 @@ class Delay(OfRecordings):
         terminal.out.print()
         first = dict([next(iter(budgets.items()))])  # all joints are too wide
         terminal.print_tables(tables.frequency_table(budgets), tables.estimator_table(first))
+        if len(budgets) > 1:
+            terminal.out.print("The other joints' estimates are in --json, and in the report.")
         terminal.warn(*with_joints({name: b.warnings for name, b in budgets.items()}))
 
 
@@ -359,6 +362,8 @@ class Report(OfRecordings):
 class Samples:
     """Copy the samples into a folder: recordings with their truth, a calibration, policies, an arm.
 
+    Those that are there already stay as they are; a changed one is replaced with --force only.
+
     README.md beside them says how each was made.
 
     Example: pupper-sysid samples
@@ -377,15 +382,17 @@ class Samples:
 
         sources = [p for p in sorted(SAMPLES.rglob("*")) if p.is_file()]
         files = {self.out / p.relative_to(SAMPLES): p for p in sources}
-        for target in files:  # before the first is written
-            refuse_overwrite(target, self.force)
+        for target, source in files.items():  # before the first is written
+            if not (target.is_file() and filecmp.cmp(source, target, shallow=False)):
+                refuse_overwrite(target, self.force)
         for target, source in files.items():
-            write_bytes(target, source.read_bytes(), self.force)
+            if not target.exists() or self.force:  # else it is the same
+                write_bytes(target, source.read_bytes(), self.force)
         if self.json:
             return terminal.print_json({"files": list(files)})
         for target in files:
             terminal.out.print(f"  {target}")
         terminal.err.print(
-            f"Wrote {len(files)} files. Next: "
+            f"{len(files)} files in {self.out}. Next: "
             + terminal.command("pupper-sysid", "delay", self.out / "sweep.csv")
         )

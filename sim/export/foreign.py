@@ -214,7 +214,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
 def _armature(text: str, joint: str | None) -> Armature:
     """What an armature includes by the head of our own exports, else the servo alone."""
     heads = re.findall(
-        r"Numbers of ([^;]*) are for [^;]*; armature: ([^;]*);", " ".join(text.split())
+        r"Numbers of ([^;]*) (?:hold for:|are for) [^;]*; armature: ([^;]*);",
+        " ".join(text.split()),
     )
     said = next((words for names, words in heads if joint in (None, *names.split(", "))), "")
     return "servo and load" if said == ARMATURES["servo and load"] else "servo"

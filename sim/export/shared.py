@@ -42,7 +42,7 @@ KNOWN = {"yes": "measured", "ratio only": "ratio measured, scale assumed", "no":
 """How well a number is known, by `Quantity.identified`."""
 INCLUDES_LINK = (
     "An armature with the link and load counts their inertia twice in a model whose bodies have "
-    "it, too: take it off by the export's link-inertia or model."
+    "it, too: take it off with `link_inertia` or `model`."
 )
 _LONGEST_STEP_S = 0.1
 _FASTEST_HZ, _AMPLITUDE_RAD = 4.0, 0.3  # the sweeps' fastest common tone
@@ -141,7 +141,7 @@ class ExportedServos:
     def operating_points(self) -> Iterator[str]:
         """P gain, armature and load that the numbers hold for, joints alike in one sentence."""
         for point, names in self.calibration.operating_points().items():
-            yield f"Numbers of {', '.join(names)} are for {point}."
+            yield f"Numbers of {', '.join(names)} hold for: {point}."
         if self.links:
             links = ", ".join(f"{name} {inertia:.4g}" for name, inertia in self.links.items())
             yield f"Inertia of links that was taken off the armatures, kg·m²: {links}."

@@ -121,7 +121,7 @@ def _load(trials: Sequence[Trial]) -> str:
     """What the joint carried, in words."""
     stated = loads_in_words(trials)
     if not stated:
-        return "the joint's link and what hung on it; no load is stated"
+        return "none stated, so the joint's link and whatever hung on it"
     return stated + (", runs without a stated load" if any(t.load is None for t in trials) else "")
 
 

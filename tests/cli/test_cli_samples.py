@@ -19,6 +19,9 @@ def test_the_samples_are_copied_whole_and_never_over_other_files(capsys, here):
     assert made == {p.relative_to(SAMPLES) for p in SAMPLES.rglob("*") if p.is_file()}
     assert all((SAMPLES / p).read_bytes() == (Path("samples") / p).read_bytes() for p in made)
     assert str(Path("samples") / "sweep.csv") in out
+    when = Path("samples/arm.csv").stat().st_mtime_ns
+    ran(capsys, "samples")
+    assert Path("samples/arm.csv").stat().st_mtime_ns == when, "the same files stay"
     Path("samples/sweep.csv").write_text("mine")
     Path("samples/README.md").unlink()
     assert "exists already" in refused(capsys, pupper_sysid, "samples")

@@ -11,7 +11,13 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import undescribed
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.joint_fit import unidentified
-from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, low_passed, with_delays
+from pupper_sysid.sysid.fit.misfit import (
+    Explanation,
+    decided,
+    explanations,
+    low_passed,
+    with_delays,
+)
 from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, Structure, candidate, servo_structure
