@@ -577,9 +577,10 @@ def _cannot_open(device: str, error: BaseException) -> str:
     elif "exclusively" in text or "busy" in text or "resource temporarily" in text:
         hint = "Another program has it open; stop that first, only one may command the servos."
     elif not Path(device).exists():
-        hint = (
-            "There is no such device: check the cable and the name; `pupper-sysid scan` lists the "
-            "serial ports (a USB adapter is /dev/ttyUSB0 or /dev/ttyACM0)."
+        return (
+            f"{device} cannot be opened: there is no such device. Check the cable and the name; "
+            "`pupper-sysid scan` lists the serial ports (a USB adapter is /dev/ttyUSB0 or "
+            "/dev/ttyACM0)."
         )
     else:
         hint = "Check the cable and the name."

@@ -140,7 +140,7 @@ sweep --joints "" | --joints is empty
 sweep --playback /dev/zero | /dev/zero is not a file
 sweep --bus usb | write emulated, esp32
 sweep --bus feetech:/dev/ttyUSB0@fast | 'fast' is no baud rate
-sweep --out a.csv --bus feetech:/dev/no-such-port | There is no such device
+sweep --out a.csv --bus feetech:/dev/no-such-port | there is no such device
 sweep --out a.csv --bus [esp32:/tmp/no-folder/socket esp32:no.socket] | no answer. On the robot
 sweep --bus esp32 --out a.csv --truth | only a new recording of the emulated robot
 sweep --bus esp32 --real-time | always runs in real time

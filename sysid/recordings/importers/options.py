@@ -32,7 +32,7 @@ from pupper_sysid.common.border import read_yaml, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.dialect import decimal, is_decimal
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import SECONDS
+from pupper_sysid.sysid.recordings.importers.columns import SECONDS, UNITS
 
 COUNT_RAD = 2 * np.pi / 4096
 """One count of an encoder with 4,096 a turn."""
@@ -114,14 +114,14 @@ class Unit:
 def unit(text: str, name: str = "`unit`") -> Unit:
     """The unit that `text` names; `name` says where it was given, for messages.
 
-    `rad`, `mrad`, `deg` or `turns`; `counts:4096` with the counts of a turn, half of which is 0
-    rad, or `counts:4096:0` with the count that is; `percent:RANGE_RAD` of −100 … 100 over a range;
+    `rad`, `mrad`, `deg` or `turns`, or other words for them (`degrees`); `counts:4096` with the
+    counts of a turn, half of which is 0 rad, or `counts:4096:0` with the count that is; `percent:RANGE_RAD` of −100 … 100 over a range;
     `scale:RAD_PER_UNIT`.
 
-    >>> unit("deg").scale * 180 == np.pi, unit("counts:4096").zero, unit("percent:4").scale
+    >>> unit("degrees").scale * 180 == np.pi, unit("counts:4096").zero, unit("percent:4").scale
     (True, 2048.0, 0.02)
     """
-    word, _, value = text.strip().partition(":")
+    word, _, value = UNITS.get(text.strip().lower(), text.strip()).partition(":")
     if word in _ANGLE_SCALES and not value:
         return Unit(_ANGLE_SCALES[word])
     number, _, middle = value.partition(":")

@@ -369,8 +369,10 @@ def unknown_json(keys: Iterable[str]) -> str:
 def unknown_folder(names: Iterable[str]) -> str:
     """Why a folder has no known layout."""
     present = set(names)
+    if not present:
+        return "it is an empty folder. Give a log's file or folder."
     return (
-        f"it is a folder without a log: it has {listed(sorted(present)[:20]) or 'nothing'}. SAGE: "
+        f"it is a folder without a log: it has {listed(sorted(present)[:20])}. SAGE: "
         f"{_lack(present, 'control.csv', 'state_motor.csv', 'joint_list.txt')}; LeRobot: "
         f"{_lack(present, 'meta', 'data')}; rosbag2: {_lack(present, 'metadata.yaml')}. Give a "
         "log's file or folder."

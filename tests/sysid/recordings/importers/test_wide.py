@@ -113,7 +113,7 @@ def test_a_folder_of_logs_is_no_recording(tmp_path):
         load(tmp_path)
     assert [path.name for path in logs_in(tmp_path)] == ["a.csv", "b.csv"]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="folder without a log"):
+    with pytest.raises(InputError, match="an empty folder"):
         logs_in(tmp_path / "empty")
 
 
