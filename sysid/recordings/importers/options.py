@@ -115,8 +115,8 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     """The unit that `text` names; `name` says where it was given, for messages.
 
     `rad`, `mrad`, `deg` or `turns`, or other words for them (`degrees`); `counts:4096` with the
-    counts of a turn, half of which is 0 rad, or `counts:4096:0` with the count that is; `percent:RANGE_RAD` of −100 … 100 over a range;
-    `scale:RAD_PER_UNIT`.
+    counts of a turn, half of which is 0 rad, or `counts:4096:0` with the count that is;
+    `percent:RANGE_RAD` of −100 … 100 over a range; `scale:RAD_PER_UNIT`.
 
     >>> unit("degrees").scale * 180 == np.pi, unit("counts:4096").zero, unit("percent:4").scale
     (True, 2048.0, 0.02)
