@@ -202,6 +202,8 @@ class Apart:
         With the noise that is left without the other recordings.
     point : ndarray, shape (parameters,)
     precision : ndarray, shape (parameters, parameters)
+    temperature : float
+        By which the cost of the part is divided.
     misfit : float
         Residual over noise, of all motions; NaN where that is not known.
     """
@@ -209,6 +211,7 @@ class Apart:
     part: Problem
     point: NDArray[np.float64]
     precision: NDArray[np.float64]
+    temperature: float
     misfit: float
 
 
@@ -227,7 +230,8 @@ def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) 
         temperature *= misfit**2
     prior = structure.prior_precision
     bent = (curvature(part, point, _STEP) - prior) / temperature
-    return Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), misfit)
+    precision = bent + prior + 1e-9 * np.eye(len(bent))
+    return Apart(part, point, precision, temperature, misfit)
 
 
 def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
@@ -245,7 +249,8 @@ def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference 
     """In what a recording differs from all others; None if it does not.
 
     Whether it does is asked of the difference of the two fits, in which direction of the run's own
-    readings: a large difference is beyond a parabola.
+    readings: a large difference is beyond a parabola. What does not differ is as all recordings
+    have it: numbers of the others alone may be far off along their ridge.
     """
     structure = one.part.structure
     rest = sum(o.precision for o in others)
@@ -260,8 +265,11 @@ def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference 
     for name, direction in directions.items():
         if nats[name] < _NATS:
             continue
-        points = np.clip(middle + _CHANGES[:, None] * direction, *structure.box)
-        cost = one.part.costs(points)
+        changes = _CHANGES[:, None] * direction
+        both = (one.point - changes) @ one.precision + middle @ rest
+        common = np.linalg.solve(one.precision + rest, both.T).T
+        cost = one.part.costs(np.clip(common + changes, *structure.box)) / one.temperature
+        cost += 0.5 * np.sum((common - middle) @ rest * (common - middle), axis=1)
         costs[name] = float(cost.min()), float(_CHANGES[int(np.argmin(cost))])
     name = min(costs, key=lambda n: costs[n][0])
     change, sd = costs[name][1], (directions[name] @ weight @ directions[name]) ** -0.5

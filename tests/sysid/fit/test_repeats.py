@@ -1,6 +1,8 @@
 """Recordings of one joint: those that agree are left alone, one that differs is named."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,13 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.choice import Fitted, goodness_of, undescribed
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
-from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats, fit_apart, repeats_of
+from pupper_sysid.sysid.fit.repeats import (
+    Apart,
+    Repeats,
+    compare_repeats,
+    fit_apart,
+    repeats_of,
+)
 from pupper_sysid.sysid.fit.run import Run, prepare
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
@@ -144,3 +152,28 @@ def test_the_recording_that_differs_is_named_with_its_number_and_the_factor(chan
                                 "stiffness_per_s2" if "gains" in named else named)  # fmt: skip
     assert repeats.between[place] > 0.05
     assert "tuesday differs from the other recordings" in worst.sentence("knee")
+
+
+def test_the_interval_of_a_factor_holds_it_where_the_recordings_have_ridges_of_their_own():
+    """Fits whose costs are parabolas, so that nine in ten intervals hold the true factor."""
+    rng, structure = np.random.default_rng(6104), candidate(SIMULATED[0])
+    count, truth = len(structure.names), np.log(0.8)
+    change = np.array([name == "stiffness_per_s2" for name in structure.names]) * truth
+    held = []
+    while len(held) < 200:
+        fits: dict[str, Apart] = {}
+        for name in ("monday", "tuesday"):
+            axes, _ = np.linalg.qr(rng.standard_normal((count, count)))
+            sd = np.exp(rng.uniform(np.log(0.003), np.log(0.3), count))
+            precision = (axes / sd**2) @ axes.T
+            point = np.mean(structure.box, axis=0) + change * (name == "tuesday")
+            point = point + axes @ (sd * rng.standard_normal(count))
+            part: Any = SimpleNamespace(structure=structure)
+            part.costs = lambda x, p=point, h=precision: 0.5 * np.sum((x - p) @ h * (x - p), axis=1)
+            fits[name] = Apart(part, point, precision, 1.0, 1.0)
+        repeats = compare_repeats(fits)
+        assert repeats is not None
+        for difference in repeats.differences:
+            if difference.name == "stiffness_per_s2":
+                held.append(difference.factor.low <= 0.8 <= difference.factor.high)
+    assert 0.85 <= np.mean(held) <= 0.95
