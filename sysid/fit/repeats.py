@@ -38,7 +38,6 @@ _LEAST_CHANGE = 0.05
 """Logarithm of the smallest factor that is named: servos of one batch differ by more."""
 _CHANGES = np.linspace(-1.2, 1.2, 121)
 """Logarithms of factors that are tried, from 0.3 to 3.3."""
-_GRAIN = 0.006  # standard deviation of one of them about the true factor
 _MOST = 12  # recordings that are fitted apart
 _SPREADS = np.geomspace(1 / 150, 2.0, 60)
 """Standard deviations between recordings that are tried, in those between units: from a thousandth
@@ -202,8 +201,6 @@ class Apart:
         With the noise that is left without the other recordings.
     point : ndarray, shape (parameters,)
     precision : ndarray, shape (parameters, parameters)
-    temperature : float
-        By which the cost of the part is divided.
     misfit : float
         Residual over noise, of all motions; NaN where that is not known.
     """
@@ -211,7 +208,6 @@ class Apart:
     part: Problem
     point: NDArray[np.float64]
     precision: NDArray[np.float64]
-    temperature: float
     misfit: float
 
 
@@ -230,8 +226,7 @@ def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) 
         temperature *= misfit**2
     prior = structure.prior_precision
     bent = (curvature(part, point, _STEP) - prior) / temperature
-    precision = bent + prior + 1e-9 * np.eye(len(bent))
-    return Apart(part, point, precision, temperature, misfit)
+    return Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), misfit)
 
 
 def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
@@ -248,9 +243,10 @@ def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
 def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference | None:
     """In what a recording differs from all others; None if it does not.
 
-    Whether it does is asked of the difference of the two fits, in which direction of the run's own
-    readings: a large difference is beyond a parabola. What does not differ is as all recordings
-    have it: numbers of the others alone may be far off along their ridge.
+    Whether it does and by how much is asked of the difference of the two fits, in which direction
+    of the run's own readings: a large difference is beyond a parabola. What does not differ is as
+    all recordings have it in the first; the second have it as the others alone do, which may be far
+    along their ridge, so that they do not say by how much.
     """
     structure = one.part.structure
     rest = sum(o.precision for o in others)
@@ -265,21 +261,15 @@ def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference 
     for name, direction in directions.items():
         if nats[name] < _NATS:
             continue
-        changes = _CHANGES[:, None] * direction
-        both = (one.point - changes) @ one.precision + middle @ rest
-        common = np.linalg.solve(one.precision + rest, both.T).T
-        cost = one.part.costs(np.clip(common + changes, *structure.box)) / one.temperature
-        cost += 0.5 * np.sum((common - middle) @ rest * (common - middle), axis=1)
-        costs[name] = float(cost.min()), float(_CHANGES[int(np.argmin(cost))])
-    name = min(costs, key=lambda n: costs[n][0])
-    change, sd = costs[name][1], (directions[name] @ weight @ directions[name]) ** -0.5
+        points = np.clip(middle + _CHANGES[:, None] * direction, *structure.box)
+        costs[name] = float(one.part.costs(points).min())
+    name = min(costs, key=lambda n: costs[n])
+    bent = directions[name] @ weight @ directions[name]
+    change, sd = float(directions[name] @ pull / bent), bent**-0.5
     if abs(change) < _LEAST_CHANGE:
         return None
     factor = Interval(
-        *(
-            float(np.exp(change + z * np.hypot(sd, _GRAIN)))
-            for z in (0.0, -HALF_WIDTH_SD, HALF_WIDTH_SD)
-        )
+        *(float(np.exp(change + z * sd)) for z in (0.0, -HALF_WIDTH_SD, HALF_WIDTH_SD))
     )
     return Difference(source, name, factor, float(nats[name]))
 

@@ -170,7 +170,7 @@ def test_the_interval_of_a_factor_holds_it_where_the_recordings_have_ridges_of_t
             point = point + axes @ (sd * rng.standard_normal(count))
             part: Any = SimpleNamespace(structure=structure)
             part.costs = lambda x, p=point, h=precision: 0.5 * np.sum((x - p) @ h * (x - p), axis=1)
-            fits[name] = Apart(part, point, precision, 1.0, 1.0)
+            fits[name] = Apart(part, point, precision, 1.0)
         repeats = compare_repeats(fits)
         assert repeats is not None
         for difference in repeats.differences:
