@@ -246,7 +246,8 @@ def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference 
     Whether it does and by how much is asked of the difference of the two fits, in which direction
     of the run's own readings: a large difference is beyond a parabola. What does not differ is as
     all recordings have it in the first; the second have it as the others alone do, which may be far
-    along their ridge, so that they do not say by how much.
+    along their ridge, so that they do not say by how much. The factor is as uncertain as what it
+    leaves of the difference (Birge's ratio, if that is above 1).
     """
     structure = one.part.structure
     rest = sum(o.precision for o in others)
@@ -264,8 +265,11 @@ def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference 
         points = np.clip(middle + _CHANGES[:, None] * direction, *structure.box)
         costs[name] = float(one.part.costs(points).min())
     name = min(costs, key=lambda n: costs[n])
-    bent = directions[name] @ weight @ directions[name]
-    change, sd = float(directions[name] @ pull / bent), bent**-0.5
+    direction = directions[name]
+    bent = direction @ weight @ direction
+    change = float(direction @ pull / bent)
+    left = one.point - middle - change * direction
+    sd = np.sqrt(max(left @ weight @ left / (len(left) - 1), 1.0) / bent)
     if abs(change) < _LEAST_CHANGE:
         return None
     factor = Interval(
