@@ -23,6 +23,7 @@ from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 LONG, SHORT, UNSEEN = ("prbs_excitation", "step_response"), "prbs_excitation", "chirp_sweep"
 LONG_S, SHORT_S = 60.0, 20.0
@@ -44,8 +45,9 @@ def joined(calibrations: Sequence[Calibration]) -> Calibration:
 
 def error_rad(unseen: Recording, model: Calibration, joint: str) -> float:
     """RMS of a free run against the readings."""
-    (scored,) = (m for m in compare(unseen, [model], joint).models.items() if "linear" not in m[0])
-    return scored[1].joints[joint].rmse_held_rad
+    found = compare(unseen, [model], joint).models
+    (scored,) = (m for name, m in found.items() if name != LINEAR)
+    return scored.joints[joint].rmse_held_rad
 
 
 def main(joints: tuple[str, ...] = JOINTS, seed: int = 0) -> None:

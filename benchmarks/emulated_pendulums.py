@@ -22,6 +22,8 @@ import pandas as pd
 import tyro
 from numpy.typing import NDArray
 
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sim.emulator.pendulum import (
     BenchSpec,
     Pendulum,
@@ -32,11 +34,12 @@ from pupper_sysid.sim.emulator.pendulum import (
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 LOOP_S, READ_AFTER_S, DURATION_S, RELEASE_S = 0.01, 0.002, 6.0, 2.5
 GAINS, UNSEEN = (8, 32), 16
+STEP_S = 2e-4
 MOTIONS = ("chirp", "steps", "drop")
-BAD = 0.01
 JOINT = "bench"
 SERVOS = {
     "STS3215": (BenchSpec(), Pendulum(0.25, 0.12)),
@@ -64,7 +67,7 @@ def recorded(
     servo: PendulumServoParameters,
     gain: int,
     motion: str,
-    bad: bool,
+    bad: float,
     rng: np.random.Generator,
 ) -> tuple[Recording, NDArray[np.float64]]:
     """One run, and the true positions at its readings."""
@@ -86,10 +89,9 @@ def recorded(
         true[k] = emulated.position_at(at + READ_AFTER_S)
     noisy = true + spec.reading_noise_rad * rng.standard_normal(len(true))
     reading = np.round(noisy / count) * count
-    if bad:
-        wrong = 1 + np.flatnonzero(rng.random(len(reading) - 2) < BAD)
-        size = np.exp(rng.uniform(np.log(0.02), np.log(1.5), len(wrong)))
-        reading[wrong] += np.round(size * rng.choice([-1, 1], len(wrong)) / count) * count
+    wrong = 1 + np.flatnonzero(rng.random(len(reading) - 2) < bad)
+    size = np.exp(rng.uniform(np.log(0.02), np.log(1.5), len(wrong)))
+    reading[wrong] += np.round(size * rng.choice([-1, 1], len(wrong)) / count) * count
     table = pd.DataFrame({
         "send_time_s": sent, "read_time_s": sent + READ_AFTER_S, "command_rad": command,
         "position_rad": reading, "torque_enabled": on, "joint": JOINT, "trial": 0,
@@ -109,39 +111,77 @@ def recorded(
     return Recording.from_frame(table, metadata=header, name=f"{motion}_p{gain}"), true
 
 
-def main(count: int = 3, seed: int = 0) -> None:
-    """Print the table."""
+def modelled(
+    spec: BenchSpec, servo: PendulumServoParameters, run: Recording
+) -> NDArray[np.float64]:
+    """Positions at the readings of an unseen run, by the model with the servo's numbers [rad]."""
+    loop = spec.loop(dict(spec.factory) | dict(spec.registers) | {"p": UNSEEN}, servo)
+    numbers = LoadedServoParameters(
+        duty_per_rad=servo.duty_per_rad, duty_s_per_rad=loop.d, stall_torque=servo.torque_nm,
+        back_emf=servo.back_emf_nm_s_rad, armature=servo.armature_kg_m2,
+        friction_loss=servo.friction_nm, dead_time_s=servo.dead_time_s,
+        acceleration_limit=loop.top_acceleration_rad_s2,
+    )  # fmt: skip
+    load = Load(servo.load_inertia_kg_m2, servo.gravity_nm, 0.0)
+    model = LoadedServo(numbers, UNSEEN, load, STEP_S)
+    model.reset(0.0)
+    columns = ("send_time_s", "read_time_s", "command_rad", "torque_enabled")
+    sent, read, command, on = (run.table[name].to_numpy() for name in columns)
+    edges = sent[0] + STEP_S * np.arange(1 + round((read[-1] - sent[0]) / STEP_S))
+    row = np.searchsorted(sent, edges[:-1] + 0.5 * STEP_S, "right") - 1
+    return np.interp(read, edges, [0.0, *model.rollout(command[row], on[row])])
+
+
+def _error_rad(calibration: Calibration, unseen: Recording) -> float:
+    """RMS error of a free run by the calibration as it is written."""
+    found = compare(unseen, [calibration], JOINT).models
+    (scored,) = (m for name, m in found.items() if name != LINEAR)
+    return scored.joints[JOINT].rmse_held_rad
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def main(
+    count: int = 3, seed: int = 0, bad: float = 0.01, servos: tuple[str, ...] = tuple(SERVOS)
+) -> None:
+    """Print the table; `bad` is the share of bad readings."""
 
     def rows() -> Iterable[list[object]]:
-        for name, (spec, load) in SERVOS.items():
+        for name in servos:
+            spec, load = SERVOS[name]
             for number in range(count):
                 rng = np.random.default_rng([seed, number, sum(map(ord, name))])
                 (servo,) = draw_bench(rng, load, spec).loaded
                 servo = replace(servo, hanging_rad=0.0)
                 fitted = [
-                    recorded(spec, servo, gain, motion, True, rng)[0]
+                    recorded(spec, servo, gain, motion, bad, rng)[0]
                     for gain in GAINS for motion in MOTIONS
                 ]  # fmt: skip
-                unseen = [recorded(spec, servo, UNSEEN, m, False, rng) for m in MOTIONS]
+                unseen = [recorded(spec, servo, UNSEEN, m, 0.0, rng) for m in MOTIONS]
                 begun = time.process_time()
                 result = calibrate(fitted)
                 spent = time.process_time() - begun
-                found = compare([r for r, _ in unseen], [result.calibration], JOINT)
-                scored = next(s for n, s in found.models.items() if "linear" not in n.lower())
-                own = np.concatenate([
-                    r.table["position_rad"].to_numpy() - true for r, true in unseen
-                ])  # fmt: skip
-                floor, error = float(np.sqrt(np.mean(own**2))), scored.joints[JOINT].rmse_held_rad
+                errors = [
+                    (
+                        _error_rad(result.calibration, run),
+                        _rms(run.table["position_rad"].to_numpy() - modelled(spec, servo, run)),
+                        _rms(run.table["position_rad"].to_numpy() - true),
+                    )
+                    for run, true in unseen
+                ]  # fmt: skip
+                error, own, noise = np.sqrt(np.mean(np.square(errors), axis=0))
                 block = result.calibration.joint(JOINT).servo
                 yield [
-                    name, number, mrad(error), mrad(floor), f"{error / floor:.2f}",
-                    "–" if block is None else block.structure,
-                    f"{result[JOINT].delayed_pd.scores.rmse_fresh_rad * 1e3:.1f}", f"{spent:.0f}",
+                    name, number, mrad(error), mrad(own), mrad(noise), f"{error / own:.2f}",
+                    ", ".join(mrad(one) for one, *_ in errors),
+                    "–" if block is None else block.structure, f"{spent:.0f}",
                 ]  # fmt: skip
 
     print_rows(
-        ("servo", "number", "unseen P 16, mrad", "the servo itself", "ratio", "structure",
-         "fitted, mrad", "processor s"), rows(),
+        ("servo", "number", "unseen P 16, mrad", "true numbers", "readings", "ratio",
+         ", ".join(MOTIONS), "structure", "processor s"), rows(),
     )  # fmt: skip
 
 
