@@ -28,7 +28,7 @@ _AT_GAIN = ("stiffness_per_s2", "damping_per_s", "stiffness", "damping")
 UNIT_SD = 0.15
 """Of the logarithm of a number, between units: a tenth in stall torques and speeds of one batch of
 hobby servos (the default spread in training), more between batches. With 20 s of one joint of an
-SO-101 and the four others as the prior, errors on a chirp are 0.80 to 1.31 of those with 60 s."""
+SO-101 and the four others as the prior, errors on a chirp are 0.71 to 1.05 of those with 60 s."""
 _DEAD_TIME_SD = 0.3  # the bus and the host are a part of the dead time, and another robot's
 _GAIN_SD = 0.5  # of stiffness and damping where the P gain of one of the two is not known
 _DOUBTED_SD = 0.3  # of a number whose interval is not to be trusted: the model does not describe it

@@ -1,16 +1,25 @@
 """Recordings of one joint: those that agree are left alone, one that differs is named."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.choice import Fitted, goodness_of, undescribed
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
-from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats, fit_apart, repeats_of
+from pupper_sysid.sysid.fit.repeats import (
+    Apart,
+    Repeats,
+    compare_repeats,
+    fit_apart,
+    repeats_of,
+)
 from pupper_sysid.sysid.fit.run import Run, prepare
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
@@ -144,3 +153,42 @@ def test_the_recording_that_differs_is_named_with_its_number_and_the_factor(chan
                                 "stiffness_per_s2" if "gains" in named else named)  # fmt: skip
     assert repeats.between[place] > 0.05
     assert "tuesday differs from the other recordings" in worst.sentence("knee")
+
+
+def parabolas(changes: dict[str, float], rng: np.random.Generator) -> dict[str, Apart]:
+    """Two fits whose costs are parabolas with ridges of their own; the second has other numbers."""
+    structure, fits = candidate(SIMULATED[0]), {}
+    count = len(structure.names)
+    shift = np.array([np.log(changes.get(name, 1.0)) for name in structure.names])
+    for name in ("monday", "tuesday"):
+        axes, _ = np.linalg.qr(rng.standard_normal((count, count)))
+        sd = np.exp(rng.uniform(np.log(0.003), np.log(0.3), count))
+        precision = (axes / sd**2) @ axes.T
+        point = np.mean(structure.box, axis=0) + shift * (name == "tuesday")
+        point = point + axes @ (sd * rng.standard_normal(count))
+        part: Any = SimpleNamespace(structure=structure)
+        part.costs = lambda x, p=point, h=precision: 0.5 * np.sum((x - p) @ h * (x - p), axis=1)
+        fits[name] = Apart(part, point, precision, 1.0)
+    return fits
+
+
+def factors(changes: dict[str, float], pairs: int) -> list[Interval]:
+    """Factors of the stiffness, where it is named."""
+    rng, named = np.random.default_rng(6104), []
+    while len(named) < pairs:
+        repeats = compare_repeats(parabolas(changes, rng))
+        assert repeats is not None
+        named += [d.factor for d in repeats.differences if d.name == "stiffness_per_s2"]
+    return named
+
+
+def test_the_interval_of_a_factor_holds_it_where_the_recordings_have_ridges_of_their_own():
+    named = factors({"stiffness_per_s2": 0.8}, 200)
+    assert 0.85 <= np.mean([f.low <= 0.8 <= f.high for f in named]) <= 0.97
+
+
+def test_the_interval_of_a_factor_is_wider_where_that_alone_does_not_explain_the_difference():
+    several = {"stiffness_per_s2": 0.8, "friction_rad_s2": 1.2, "dead_time_s": 0.9}
+    alone, beside = factors({"stiffness_per_s2": 0.8}, 100), factors(several, 100)
+    width = [np.median([f.high / f.low - 1 for f in each]) for each in (alone, beside)]
+    assert width[1] > 1.5 * width[0]
