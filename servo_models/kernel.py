@@ -585,7 +585,8 @@ def edges_of(
 
 def compiled() -> bool:
     """Whether the simulation has been compiled on this machine; else its first call does it."""
-    return any(Path(_evaluate.stats.cache_path).glob(f"{Path(__file__).stem}._evaluate-*.nbi"))
+    folder = _evaluate.stats.cache_path
+    return folder is None or any(Path(folder).glob(f"{Path(__file__).stem}._evaluate-*.nbi"))
 
 
 def _order(simulated: Simulated) -> NDArray[np.int64]:
