@@ -260,8 +260,8 @@ def _first_gait_imitated(kind: Kind) -> Run:
             desired_kl=0.02 if without_memory else 0.01, learning_rate=1e-5, discount=0.97,
             gae_lambda=0.9,
             # with this noise robots are slower and less exact than without, as are policies that
-            # learn with it for long; networks without a memory change four times as much per sample
-            exploration=Exploration((0.025, 0.008), (0.0, 1.0 if without_memory else 4.0)),
+            # learn with it for long
+            exploration=Exploration((0.025, 0.008), (0.0, 1.0)),
             mirror=without_memory, averaging=50,
         ),
         # after 8 rounds a policy walks as well as after 12
