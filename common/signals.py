@@ -1,9 +1,8 @@
-"""Sizes of residuals, and recursive filters: scipy.signal takes most of a second to import."""
+"""Sizes of residuals and of motions: root mean square, and that of the bulk."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 _SD_OVER_MEDIAN_SIZE = 1.4826  # of a normal distribution
@@ -18,22 +17,3 @@ def rms(*parts: ArrayLike) -> float:
 def robust_sd(values: NDArray[np.float64]) -> float:
     """Standard deviation of the bulk of zero-mean numbers, by their median size; 0 of none."""
     return _SD_OVER_MEDIAN_SIZE * float(np.median(np.abs(values))) if len(values) else 0.0
-
-
-@njit(cache=True)
-def filtered(
-    numerator: NDArray[np.float64], denominator: NDArray[np.float64], signal: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """A signal behind a filter at rest, as `scipy.signal.lfilter` (direct form II, transposed).
-
-    Numerator and denominator, of equal length, are in rising powers of the delay; `denominator[0]`
-    is 1.
-    """
-    order = len(denominator) - 1
-    state = np.zeros(order + 1)
-    out = np.empty_like(signal)
-    for n in range(len(signal)):
-        out[n] = numerator[0] * signal[n] + state[0]
-        for k in range(order):
-            state[k] = state[k + 1] + numerator[k + 1] * signal[n] - denominator[k + 1] * out[n]
-    return out

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from pupper_sysid.common.signals import filtered
+from pupper_sysid.common.filters import filtered
 from pupper_sysid.sysid.doctor.findings import REFUSE, Finding
 from pupper_sysid.sysid.doctor.signals import COARSEST_RAD, clock_findings
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum, staleness

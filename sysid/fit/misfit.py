@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from pupper_sysid.common.filters import filtered
 from pupper_sysid.common.interval import LEVEL
-from pupper_sysid.common.signals import filtered
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import (
