@@ -13,17 +13,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 
-from shared import REAL, mrad, print_rows  # isort: skip
+from shared import REAL, free_run_error_rad, mrad, print_rows  # isort: skip
 
 import tyro
 from real_recordings import JOINTS
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 LONG, SHORT, UNSEEN = ("prbs_excitation", "step_response"), "prbs_excitation", "chirp_sweep"
 LONG_S, SHORT_S = 60.0, 20.0
@@ -33,21 +31,14 @@ def beginning(motion: str, joint: str, seconds: float = 1e9) -> Recording:
     """The first seconds of a motion, of one joint."""
     whole = load(REAL / "sage_so101" / motion)
     frame = whole.to_frame().query("joint == @joint")
-    kept = frame.query(f"send_time_s < {frame['send_time_s'].min() + seconds}")
-    return Recording.from_frame(kept, metadata=whole.metadata, name=motion)
+    first = frame.query(f"send_time_s < {frame['send_time_s'].min() + seconds}")
+    return Recording.from_frame(first, metadata=whole.metadata, name=motion)
 
 
 def joined(calibrations: Sequence[Calibration]) -> Calibration:
     """One calibration of several joints."""
     joints = {name: one for c in calibrations for name, one in c.joints.items()}
     return calibrations[0].model_copy(update={"joints": joints})
-
-
-def error_rad(unseen: Recording, model: Calibration, joint: str) -> float:
-    """RMS of a free run against the readings."""
-    found = compare(unseen, [model], joint).models
-    (scored,) = (m for name, m in found.items() if name != LINEAR)
-    return scored.joints[joint].rmse_held_rad
 
 
 def main(joints: tuple[str, ...] = JOINTS, seed: int = 0) -> None:
@@ -67,7 +58,7 @@ def main(joints: tuple[str, ...] = JOINTS, seed: int = 0) -> None:
                 calibrate(short, seed=seed).calibration,
                 calibrate(short, seed=seed, prior=others).calibration,
             )
-            errors = [error_rad(unseen, model, joint) for model in models]
+            errors = [free_run_error_rad(unseen, model, joint) for model in models]
             yield [
                 joint, *map(mrad, errors), f"{errors[2] / errors[0]:.2f}",
                 f"{time.process_time() - begun:.0f}",

@@ -6,7 +6,7 @@ Each servo is stepped by MuJoCo at 1 kHz, with its position loop in counts, a de
 force and the D gain of its firmware. At P 8, 32 (and 16, unseen) it follows a chirp and random
 steps, and is lifted and dropped limp. One reading in a hundred of the fitted runs is bad: away by
 0.02 to 1.5 rad, and back at the next. The unseen runs are predicted from the calibration as it is
-written; *the servo itself* is the emulated servo without noise and counts.
+written; *true numbers* is the same model with the servo's own, *readings* their noise and counts.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import time
 from collections.abc import Iterable
 from dataclasses import replace
 
-from shared import mrad, print_rows  # isort: skip
+from shared import free_run_error_rad, mrad, print_rows  # isort: skip
 
 import numpy as np
 import pandas as pd
 import tyro
 from numpy.typing import NDArray
 
-from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.common.signals import rms
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sim.emulator.pendulum import (
     BenchSpec,
@@ -31,10 +31,8 @@ from pupper_sysid.sim.emulator.pendulum import (
     PendulumServoParameters,
     draw_bench,
 )
-from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 LOOP_S, READ_AFTER_S, DURATION_S, RELEASE_S = 0.01, 0.002, 6.0, 2.5
 GAINS, UNSEEN = (8, 32), 16
@@ -132,17 +130,6 @@ def modelled(
     return np.interp(read, edges, [0.0, *model.rollout(command[row], on[row])])
 
 
-def _error_rad(calibration: Calibration, unseen: Recording) -> float:
-    """RMS error of a free run by the calibration as it is written."""
-    found = compare(unseen, [calibration], JOINT).models
-    (scored,) = (m for name, m in found.items() if name != LINEAR)
-    return scored.joints[JOINT].rmse_held_rad
-
-
-def _rms(values: NDArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def main(
     count: int = 3, seed: int = 0, bad: float = 0.01, servos: tuple[str, ...] = tuple(SERVOS)
 ) -> None:
@@ -165,16 +152,17 @@ def main(
                 spent = time.process_time() - begun
                 errors = [
                     (
-                        _error_rad(result.calibration, run),
-                        _rms(run.table["position_rad"].to_numpy() - modelled(spec, servo, run)),
-                        _rms(run.table["position_rad"].to_numpy() - true),
+                        free_run_error_rad(run, result.calibration, JOINT),
+                        rms(run.table["position_rad"].to_numpy() - modelled(spec, servo, run)),
+                        rms(run.table["position_rad"].to_numpy() - true),
                     )
                     for run, true in unseen
                 ]  # fmt: skip
-                error, own, noise = np.sqrt(np.mean(np.square(errors), axis=0))
+                error, of_true_numbers, noise = np.sqrt(np.mean(np.square(errors), axis=0))
                 block = result.calibration.joint(JOINT).servo
                 yield [
-                    name, number, mrad(error), mrad(own), mrad(noise), f"{error / own:.2f}",
+                    name, number, mrad(error), mrad(of_true_numbers), mrad(noise),
+                    f"{error / of_true_numbers:.2f}",
                     ", ".join(mrad(one) for one, *_ in errors),
                     "–" if block is None else block.structure, f"{spent:.0f}",
                 ]  # fmt: skip

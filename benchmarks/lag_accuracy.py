@@ -26,6 +26,7 @@ import tyro
 from random_robots import sweep_random_robot
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.signals import rms
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
 from pupper_sysid.sysid.lag.tone import tone_lags, tone_response, tone_weights
@@ -83,11 +84,6 @@ def measure(seed: int) -> Result | None:
         abs(lattice.poll_period_s - robot.spec.poll_period_s), lattice.kind,
         errors | {OURS: budget.lag_s.value - truth},
     )  # fmt: skip
-
-
-def rms(values: np.ndarray) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def main(robots: int = 240, workers: int = 2) -> None:

@@ -273,8 +273,9 @@ def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference 
     direction = directions[name]
     bent = direction @ weight @ direction
     change = float(direction @ pull / bent)
-    left = one.point - middle - change * direction
-    sd = np.sqrt(max(left @ weight @ left / (len(left) - 1), 1.0) / bent)
+    unexplained = one.point - middle - change * direction
+    birge = unexplained @ weight @ unexplained / (len(unexplained) - 1)
+    sd = np.sqrt(max(birge, 1.0) / bent)
     if abs(change) < _LEAST_CHANGE:
         return None
     factor = Interval(

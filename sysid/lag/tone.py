@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.signals import rms
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.lag.step_response import LONGEST_S, HeldCommand, past_bins, past_tones
@@ -132,7 +133,7 @@ def tone_response(
         period = np.floor((time - start) * frequency).astype(int)
         # rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
         fit = block_bootstrap(design, value, period, rng, draws, fewest=8)
-        residual = float(np.sqrt(np.mean((design @ fit.solution - value) ** 2)))
+        residual = rms(design @ fit.solution - value)
         # the spread of few blocks around their own fit lacks their lost degrees of freedom
         drawn = fit.inflated(np.sqrt(fit.blocks / max(fit.blocks - design.shape[1] / 2, 1.0)))
         return complex(phasors(fit.solution)[0]), phasors(drawn)[:, 0], residual
@@ -468,7 +469,7 @@ def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) ->
         fit = block_bootstrap(design, value, block, rng, _TONE_DRAWS)
         # what was fitted away from the residuals is missing from their spread
         inflate = np.sqrt(len(value) / (len(value) - design.shape[1]))
-        residual = float(inflate * np.sqrt(np.mean((design @ fit.solution - value) ** 2)))
+        residual = float(inflate * rms(design @ fit.solution - value))
         return phasors(fit.solution), phasors(fit.inflated(inflate)), residual
 
     raw = drawn(trial.read_time_s[rows], trial.position_rad[rows])
